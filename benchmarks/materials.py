@@ -3,7 +3,7 @@
     scripts/run.sh python benchmarks/materials.py [--encoder FILE] [--worlds 12] [--places 4] [--json FILE]
 
 Each world is drawn twice. In one drawing friction goes with the look of the ground (``tells``); in the other one every
-part of it has the friction of another kind than it looks like (``lies``), where an encoder should not be further off
+part of it has that of a kind drawn anew (``lies``), where an encoder should not be further off
 than a user's constant. Both have many patches, for in other worlds nearly all of the ground is of one kind. Printed for
 images, a sweep and both, over cells in view: the correlation of H_d with the truth where vegetation is deeper than
 10 cm and over all cells, the share of cells that 90 % bands of H_d hold, the correlation of the logarithm of friction,

@@ -18,6 +18,7 @@ from monoforce_ros.effects.catalogue import (
     EffectError,
     drive_speeds,
     effect_values,
+    only_effect,
     recorded_commands,
     recorded_motion,
     turned_effects,
@@ -671,3 +672,10 @@ def test_an_effect_grows_linearly_between_two_times():
 
 def test_the_scrub_of_motors_is_whole_where_the_dry_friction_of_the_physics_is():
     assert PhysicsOptions().slip_regularisation == drive_torque_limit._TURNING
+
+
+def test_a_property_of_one_effect_is_refused_where_none_or_several_have_it():
+    assert only_effect(lambda effect: effect.nameless) == "learned_term"
+    for has in (lambda effect: effect.name == "none", lambda effect: effect.stage == "body"):
+        with pytest.raises(EffectError, match="of which there is one"):
+            only_effect(has)

@@ -214,7 +214,7 @@ def diagnose(
     whole = None if decision.trial is None else search.refit(decision.trial.effects)
     effects = () if whole is None else _ranked(search, whole, _estimated(search, whole, outcome, sensors))
     if repetition is not None:
-        effects = repetition.judged(effects)
+        effects = repetition.judged(effects, settings.thresholds)
     fitted: Effects = () if whole is None else whole.effects
     measured = Measured.beside(decision.verdict, effects, concluded.gap, sensors, robot)
     verdict = measured.verdict

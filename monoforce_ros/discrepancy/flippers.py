@@ -11,10 +11,10 @@ from monoforce_ros.bags import JointRecord
 from monoforce_ros.core import NANOSECOND
 from monoforce_ros.discrepancy.comparison import GapRow
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
-from monoforce_ros.effects import CATALOGUE, flipper_place
+from monoforce_ros.effects import CATALOGUE, flipper_place, only_effect
 from monoforce_ros.robots import RobotModel, servo_response
 
-BLOCKED = next(name for name, effect in CATALOGUE.items() if effect.joints_measure)
+BLOCKED = only_effect(lambda effect: effect.joints_measure)
 """Effect that measured angles of flippers show."""
 _PIECE, _STEP = 2.0, 0.02
 """Length of the pieces, that of a diagnosed window, and time step of the modelled servos, below their time constants

@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 
 from monoforce_ros.discrepancy.estimates import EffectEstimate, ParameterEstimate
 from monoforce_ros.effects import CATALOGUE, Product
-
-_QUANTILE = 1.96
-"""Of the normal distribution, for an interval of 95 %."""
 
 
 def jackknife_error(values: Sequence[float], parts: int) -> float:
@@ -32,7 +30,9 @@ def jackknife_error(values: Sequence[float], parts: int) -> float:
     return math.sqrt((parts - 1) * float(np.var(values)))
 
 
-def widened(estimate: EffectEstimate, found: Sequence[Mapping[str, float]], parts: int) -> EffectEstimate:
+def widened(
+    estimate: EffectEstimate, found: Sequence[Mapping[str, float]], parts: int, confidence: float = 0.95
+) -> EffectEstimate:
     """The estimate with intervals as wide as searches without parts of the recording ask for.
 
     An interval that is wider already, by the blocks of the whole recording, stays: three to seven searches estimate a
@@ -43,7 +43,9 @@ def widened(estimate: EffectEstimate, found: Sequence[Mapping[str, float]], part
         estimate: of the whole recording.
         found: values of the same effect in each search that found it.
         parts: number of searches.
+        confidence: of the intervals.
     """
+    quantile = NormalDist().inv_cdf(0.5 + 0.5 * confidence)
     effect = CATALOGUE[estimate.name]
     known = {parameter.name: parameter for parameter in effect.parameters}
     usual = {key: estimate.in_file.get(key, parameter.neutral) for key, parameter in known.items()}
@@ -51,14 +53,14 @@ def widened(estimate: EffectEstimate, found: Sequence[Mapping[str, float]], part
     for key, value in estimate.parameters.items():
         error = jackknife_error([values[key] for values in found if math.isfinite(values.get(key, math.nan))], parts)
         own = known[key]
-        parameters[key] = _at_least(value, _QUANTILE * error, usual[key], (own.low, own.high))
+        parameters[key] = _at_least(value, quantile * error, usual[key], (own.low, own.high))
     products = dict(estimate.products)
     by_name = {product.name: product for product in effect.products}
     for key, value in estimate.products.items():
         product = by_name[key]
         error = jackknife_error(_product_values(product, found), parts)
         neutral = product.of(*(usual[factor] for factor in product.factors))
-        products[key] = _at_least(value, _QUANTILE * error, neutral, (-math.inf, math.inf))
+        products[key] = _at_least(value, quantile * error, neutral, (-math.inf, math.inf))
     return replace(estimate, parameters=parameters, products=products)
 
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from monoforce_ros.discrepancy.fit import OUTLIER, flat, with_values
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
-from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE, only_effect
 
-LEARNED = next(name for name, effect in CATALOGUE.items() if effect.nameless)
+LEARNED = only_effect(lambda effect: effect.nameless)
 """Effect that stands for a formula."""
 _STEP = 0.02
 """Step of the finite differences, as a share of the robot's weight."""

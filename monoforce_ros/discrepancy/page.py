@@ -162,21 +162,17 @@ def _result(top: Headline, robot_file: Path | None, in_file: Sequence[str], left
         actions.insert(0, f"to predict with these effects, give {robot_file.name} of this folder as the robot")
     elif robot_file is not None:
         actions.insert(0, f"keep your robot file: {robot_file.name} of this folder does not predict better")
-    wrong = (
-        f"<ul class='found'>{_list_items(top.findings[:_MOST_LISTED])}</ul>"
-        if top.findings
-        else "<ul><li>Nothing</li></ul>"
-    )
-    sure = f"{_list_items(top.doubts[:_MOST_LISTED], 'doubt')}{_list_items(top.confidence[:_MOST_LISTED])}"
+    wrong = _list_items(top.findings[:_MOST_LISTED] or ("nothing",))
+    sure = _list_items(top.doubts[:_MOST_LISTED], "doubt") + _list_items(top.confidence[:_MOST_LISTED])
     left = f"<p class='left'>{html.escape(top.unexplained)}</p>" if top.unexplained else ""
     columns = "".join(
-        f"<div><h3>{heading}</h3>{content}</div>"
-        for heading, content in (
-            ("What differs from the robot file" if top.of_file else "What is wrong", wrong),
-            ("How sure", f"<ul>{sure}</ul>" if sure else ""),
-            ("What to do", f"<ul>{_list_items(actions[:_MOST_LISTED])}</ul>" if actions else ""),
+        f"<div><h3>{heading}</h3><ul class='{kind}'>{items}</ul></div>"
+        for heading, kind, items in (
+            ("What differs from the robot file" if top.of_file else "What is wrong", "found", wrong),
+            ("How sure", "sure", sure),
+            ("What to do", "actions", _list_items(actions[:_MOST_LISTED])),
         )
-        if content
+        if items
     )
     rest = [text for texts in (top.findings, top.doubts, top.confidence, actions) for text in texts[_MOST_LISTED:]]
     below = card(f"<ul>{_list_items(rest)}</ul>", heading="Also") if rest else ""

@@ -108,7 +108,11 @@ class Repetition:
         losses = replace(again.losses, variance_ratio=decision.losses.variance_ratio)
         return replace(again, remarks=(*again.remarks, f"not added: {remark}"), losses=losses)
 
-    def judged(self, effects: Sequence[EffectEstimate]) -> tuple[EffectEstimate, ...]:
+    def judged(
+        self,
+        effects: Sequence[EffectEstimate],
+        thresholds: Thresholds = Thresholds(),  # noqa: B008
+    ) -> tuple[EffectEstimate, ...]:
         """The effects of the whole recording, each with how often it was found again, and with intervals as wide as
         the values that were found then ask for.
 
@@ -127,7 +131,7 @@ class Repetition:
             again = [values for entry in done for name, values in entry.effects if name == effect.name]
             result.append(
                 replace(
-                    widened(effect, again, len(done)),
+                    widened(effect, again, len(done), thresholds.confidence),
                     indistinguishable=(*effect.indistinguishable, *support.instead),
                     found_again=(support.found, support.repetitions),
                     named_otherwise=support.named_otherwise,

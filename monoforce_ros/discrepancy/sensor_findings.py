@@ -18,12 +18,12 @@ from monoforce_ros.discrepancy.hypothesis import Effects, Predictions
 from monoforce_ros.discrepancy.selection import Search
 from monoforce_ros.discrepancy.thresholds import Thresholds
 from monoforce_ros.discrepancy.wheels import WheelFinding, changed_drives, compare_with_wheels
-from monoforce_ros.effects import CATALOGUE
+from monoforce_ros.effects import CATALOGUE, only_effect
 from monoforce_ros.robots import RobotModel
 
-_CLOCK = next(name for name, effect in CATALOGUE.items() if effect.gyro_measures and effect.shifts)
+_CLOCK = only_effect(lambda effect: effect.gyro_measures and effect.shifts)
 """Effect by which the poses' clock differs from the gyro's."""
-_BIAS = next(name for name, effect in CATALOGUE.items() if effect.gyro_measures and not effect.identified)
+_BIAS = only_effect(lambda effect: effect.gyro_measures and not effect.identified)
 """Effect of the gyro itself, which its readings show."""
 
 

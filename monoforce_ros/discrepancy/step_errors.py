@@ -14,7 +14,6 @@ from monoforce_ros.discrepancy.gap import residual_scale
 from monoforce_ros.discrepancy.hypothesis import Effects, Predictions, corrected_evidence
 from monoforce_ros.discrepancy.kinematic_baseline import HORIZON, StepComparison, compare_on_steps, step_starts
 from monoforce_ros.discrepancy.left_out_stretches import LeftOut
-from monoforce_ros.discrepancy.trial import folds_of
 from monoforce_ros.robots import RobotModel
 
 _MOST = 120
@@ -42,15 +41,14 @@ def compare_after_steps(
     motion = evidence.smoothed.motion
     possible = LeftOut.of(evidence, robot).starts(evidence, HORIZON, _SPACING)
     starts = step_starts(evidence.commands, np.sort(possible))
+    selected_apart = parts is not None
     if parts is not None:
         starts = parts.judged(starts, HORIZON)
     starts = starts[:: max(1, -(-len(starts) // _MOST))]
     if not len(starts):
         return None
-    folds = folds_of(starts, 2) if parts is None else parts.part_of(starts)
-    found = dict.fromkeys(np.unique(folds).tolist(), effects)
-    if parts is not None:
-        found = {fold: parts.effects[fold] for fold in found}
+    found = parts or HeldOut((effects, effects), int(starts[0]))
+    folds = found.part_of(starts)
     samples = np.array([0.5, 1.0, 1.5, HORIZON])
     scale = residual_scale(np.zeros((len(samples), 3)), evidence.cut(starts, samples), None)
 
@@ -62,16 +60,16 @@ def compare_after_steps(
         if not effects:
             return before, None
         after = before.copy()
-        for fold, acting in found.items():
-            if not acting:
-                continue
-            fit = fit_effects(predictions(at[folds != fold]), [acting], scale, iterations=4)
-            after[folds == fold] = _distance(predictions(at[folds == fold]), fit.effects)
+        for part, acting in enumerate(found.effects):
+            inside = folds == part
+            if acting and inside.any():
+                fit = fit_effects(predictions(at[~inside]), [acting], scale, iterations=4)
+                after[inside] = _distance(predictions(at[inside]), fit.effects)
         return before, after
 
     reckoned = dead_reckoning_errors(evidence, robot, starts, samples, folds)
     compared = compare_on_steps(motion, evidence.commands, starts, folds, errors, reckoned)
-    return None if compared is None else replace(compared, selected_apart=parts is not None)
+    return None if compared is None else replace(compared, selected_apart=selected_apart)
 
 
 def _distance(predictions: Predictions, effects: Effects) -> np.ndarray:

@@ -28,7 +28,7 @@ from monoforce_ros.discrepancy.wheel_model import (
     response_of,
 )
 from monoforce_ros.discrepancy.wheel_units import PLAUSIBLE
-from monoforce_ros.effects import CATALOGUE, wheel_effects
+from monoforce_ros.effects import only_effect, wheel_effects
 from monoforce_ros.robots import RobotModel
 
 _STEP, _FINE_STEP = 0.04, 0.01
@@ -49,7 +49,7 @@ _LARGEST_MODEL = 5
 """Largest number of effects in a wheel model: dead time, three limits of the twist and a lag."""
 _MOST_EXCHANGES = 3
 """Of a model that are fitted in full."""
-_GAIN = next(name for name, effect in CATALOGUE.items() if effect.like_ratio)
+_GAIN = only_effect(lambda effect: effect.like_ratio)
 """Stands for a fitted ratio among what effects exclude."""
 _SAME_RATIO = 0.02
 """Relative difference of the measured speed ratio from the known radius' within which they are one: a worn tyre's."""

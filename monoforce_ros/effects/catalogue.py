@@ -6,7 +6,7 @@ import importlib
 import inspect
 import math
 import pkgutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,6 +53,18 @@ def _discover() -> dict[str, Effect]:
 
 CATALOGUE: dict[str, Effect] = _discover()
 """Effects by name, sorted by stage."""
+
+
+def only_effect(has: Callable[[Effect], object]) -> str:
+    """Name of the one effect with a property.
+
+    Raises:
+        EffectError: none or several have it.
+    """
+    found = [name for name, effect in CATALOGUE.items() if has(effect)]
+    if len(found) != 1:
+        raise EffectError(f"effects with a property of which there is one: got {found or 'none'}")
+    return found[0]
 
 
 def speed_effects() -> tuple[Effect, ...]:

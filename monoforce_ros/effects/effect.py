@@ -127,11 +127,14 @@ class Effect(ABC):
     """The effect in a few words of somebody who repairs robots, for lists of what else it could be."""
     remedy: ClassVar[str] = "use the written robot file, or mend the robot and record again"
     """What to check on the robot where it was found, as an order without a full stop."""
+    compared: ClassVar[str] = ""
+    """How its sentence compares it with the model: as a ``factor`` on what the robot's file says, or as a ``distance``
+    from that; empty where it gives values as they are."""
     uncertainty: ClassVar[str] = ""
     """Setting of a prediction's ensemble, ``friction`` or ``gain``, that is the standard deviation of the first
     parameter: about its value where that is a factor, else absolute."""
     one_sided: ClassVar[bool] = False
-    """Whether it changes one side of the robot alone, so that the robot's mirror image moves otherwise."""
+    """Whether it changes both sides differently, so that the robot's mirror image moves otherwise."""
     like_ratio: ClassVar[bool] = False
     """Whether wheels show it as another ratio of their speeds to the commanded ones."""
     like_track_width: ClassVar[bool] = False
@@ -141,6 +144,8 @@ class Effect(ABC):
     the base, or ``motors`` (both accelerations)."""
     nameless: ClassVar[bool] = False
     """Whether it is a formula for what the catalogue has no name for."""
+    fitted_in_training: ClassVar[bool] = False
+    """Whether the training of an encoder fits it to the vegetation that a robot drove through."""
     joints_measure: ClassVar[bool] = False
     """Whether comparing measured joint angles with commanded ones measures it."""
     order: ClassVar[int | None] = None
@@ -303,6 +308,11 @@ class Effect(ABC):
             in_file: of the robot's file.
             outside: parameters whose confidence interval does not hold the file's value.
         """
+        apart = {key: value for key, value in in_file.items() if key in values}
+        if self.compared == "factor":
+            return {**values, **{key: values[key] / value for key, value in apart.items()}}
+        if self.compared == "distance":
+            return {**values, **{key: values[key] - value for key, value in apart.items()}}
         return values
 
     def first_values(self, robot: RobotModel) -> list[dict[str, float]]:
@@ -333,6 +343,8 @@ class Effect(ABC):
             return "changes drive speeds but has no order: set its position among the command effects"
         if self.uncertainty not in ("", "friction", "gain"):
             return f"uncertainty: got {self.uncertainty!r}, expected friction, gain or nothing"
+        if self.compared not in ("", "factor", "distance"):
+            return f"compared: got {self.compared!r}, expected factor, distance or nothing"
         if self.limits not in ("", "drives", "yaw_rate", "acceleration", "yaw_acceleration", "motors"):
             return f"limits: got {self.limits!r}, expected drives, yaw_rate, acceleration, yaw_acceleration or motors"
         listed = {

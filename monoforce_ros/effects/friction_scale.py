@@ -25,6 +25,7 @@ class FrictionScale(Effect):
     formula = "μ ← factor μ"
     source = "wet, loose or icy ground"
     cause = "slippery or grippy ground"
+    compared = "factor"
     remedy = "look at tyres and ground; drive slower in turns and when braking"
     uncertainty = "friction"
     parameters = (Parameter("factor", "-", 1.0, 0.02, 3.0, 0.3, "true over mapped friction"),)
@@ -59,9 +60,3 @@ class FrictionScale(Effect):
         """What it means for the robot; see :class:`Effect`."""
         factor = values["factor"]
         return f"The ground grips {percent_change(factor, 'less than assumed: it is slippery', 'more than assumed')}."
-
-    def beyond(
-        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
-    ) -> Mapping[str, float]:
-        """A factor on the model's friction; see :class:`Effect`."""
-        return {**values, **{key: values[key] / known for key, known in in_file.items() if key in values}}

@@ -25,6 +25,7 @@ class RotationCentre(Effect):
     formula = "c_x ← c_x + x"
     source = "lateral friction in proportion to load; instantaneous centre of rotation (Mandow et al. 2007)"
     cause = "turning about another point"
+    compared = "distance"
     remedy = "look for a load ahead or behind, and for tyres of unequal grip or pressure"
     parameters = (Parameter("x", "m", 0.0, -0.5, 0.5, 0.1, "centre of mass forward of the modelled one"),)
     identified = ("x",)
@@ -51,9 +52,3 @@ class RotationCentre(Effect):
             f"{'ahead of' if values['x'] > 0 else 'behind'} the one that its "
             "model turns about."
         )
-
-    def beyond(
-        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
-    ) -> Mapping[str, float]:
-        """The distance from the model's centre; see :class:`Effect`."""
-        return {**values, **{key: values[key] - known for key, known in in_file.items() if key in values}}

@@ -24,6 +24,7 @@ class TerrainSoftness(Effect):
     formula = "e ← e / factor, d ← d / factor"
     source = "loose soil"
     cause = "soft ground or tyres"
+    compared = "factor"
     remedy = "look at the tyres' pressure, and for mud, sand or snow"
     parameters = (Parameter("factor", "-", 1.0, 0.1, 100.0, 3.0, "mapped over true stiffness"),)
     identified = ("factor",)
@@ -58,9 +59,3 @@ class TerrainSoftness(Effect):
             if values["factor"] >= 1.0
             else f"The ground or the tyres are {1.0 / values['factor']:.1f} times as hard as assumed."
         )
-
-    def beyond(
-        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
-    ) -> Mapping[str, float]:
-        """A factor on the model's softness; see :class:`Effect`."""
-        return {**values, **{key: values[key] / known for key, known in in_file.items() if key in values}}

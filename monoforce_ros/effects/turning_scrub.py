@@ -21,6 +21,7 @@ class TurningScrub(Effect):
     formula = "u - ū ← (u - ū) / factor, ū the mean of the drives"
     source = "Mandow et al. 2007, experimental kinematics of skid-steer vehicles"
     cause = "turning faster or slower than the model"
+    compared = "factor"
     remedy = "set the wheel separation multiplier of the base controller (diagnose --export)"
     like_track_width = True
     parameters = (Parameter("track_width_factor", "-", 1.0, 0.3, 4.0, 0.3, "effective over modelled track width"),)
@@ -42,9 +43,3 @@ class TurningScrub(Effect):
         return (
             f"The robot turns {percent_change(1 / factor, 'less', 'more')} than its model does with these wheel speeds."
         )
-
-    def beyond(
-        self, values: Mapping[str, float], in_file: Mapping[str, float], outside: frozenset[str]
-    ) -> Mapping[str, float]:
-        """A factor on the model's scrub; see :class:`Effect`."""
-        return {**values, **{key: values[key] / known for key, known in in_file.items() if key in values}}

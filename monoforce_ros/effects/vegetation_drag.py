@@ -24,6 +24,7 @@ class VegetationDrag(Effect):
     formula = "f = -c A (H_g - H_t) (v + v_y v/|v|)"
     source = "viscous resistance of grass and brush, and speed-independent bending of stems"
     cause = "plants"
+    fitted_in_training = True
     remedy = "look at how high and how dense the plants are; record a lidar so that the map shows them"
     parameters = (
         Parameter("coefficient", "N s/m⁴", 0.0, 0.0, 1e6, 1e4, "drag per area, height and speed"),

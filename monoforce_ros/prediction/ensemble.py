@@ -17,6 +17,8 @@ from monoforce_ros.terrain import TerrainMap
 
 _STARTS = 5
 """Random numbers of a member that vary its start; those of effects follow."""
+_UNCERTAIN = tuple(effect for effect in reversed(CATALOGUE.values()) if effect.uncertainty)
+"""Effects that vary in every ensemble."""
 
 COVERAGE = 0.9
 """Share of outcomes that the band should contain."""
@@ -110,7 +112,7 @@ def spread(predictor: Predictor, prediction: Prediction, twists: np.ndarray, set
     """
     count = settings.members
     random = np.random.default_rng(settings.seed)
-    drawn = _antithetic(random, count, _STARTS + sum(bool(effect.uncertainty) for effect in CATALOGUE.values()))
+    drawn = _antithetic(random, count, _STARTS + len(_UNCERTAIN))
     robot = _varied_robot(predictor.robot, drawn, settings)
     motions = [prediction.motion] * count
     start = _varied_start(start_states([prediction.motion]), drawn, settings)
@@ -204,8 +206,7 @@ def _varied_robot(robot: RobotModel, drawn: torch.Tensor, settings: EnsembleSett
             varied[key] = (value + unit * (high - low) / 3.92).clamp(low, high)
         effects[name] = varied
     deviations = {"friction": settings.friction, "gain": settings.gain}
-    uncertain = [effect for effect in reversed(CATALOGUE.values()) if effect.uncertainty]
-    for column, effect in enumerate(uncertain, start=_STARTS):
+    for column, effect in enumerate(_UNCERTAIN, start=_STARTS):
         parameter, change = effect.parameters[0], deviations[effect.uncertainty] * drawn[:, column]
         values = effects.setdefault(effect.name, {parameter.name: parameter.neutral})
         value = torch.as_tensor(values[parameter.name], dtype=torch.float32)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from monoforce_ros.effects import CATALOGUE, controls
+from monoforce_ros.effects import controls, only_effect
 from monoforce_ros.encoder import EncoderConfig
 from monoforce_ros.physics import PhysicsOptions, State, rollout
 from monoforce_ros.robots import RobotModel
@@ -18,7 +18,7 @@ from monoforce_ros.training.recording_samples import CHUNK, RecordingSamples
 from monoforce_ros.training.samples import Targets, targets
 from monoforce_ros.training.trajectory_residual import robust_loss
 
-EFFECT = next(name for name, effect in CATALOGUE.items() if effect.commissioned_over == "vegetation")
+EFFECT = only_effect(lambda effect: effect.fitted_in_training)
 """Effect of the drag that is fitted."""
 TALL = 0.1
 """Least height of vegetation above the supporting terrain [m]."""
